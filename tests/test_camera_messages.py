@@ -367,22 +367,6 @@ def test_jpeg_files_are_kept_unless_asked(quality: str, tmp_path: Path) -> None:
     assert any("--transcode" in note for note in summary.notes)
 
 
-def test_what_grows_is_explained(tmp_path: Path) -> None:
-    """The same JPEG file again and again is one to zstd, and a packet each to a video."""
-    recorded = CODED["jpeg-format-plain"](frames=40)
-    images = [n for n, item in enumerate(recorded.messages) if item.msgtype in PICTURES]
-    first = recorded.messages[images[0]].values["data"]
-    for n in images:
-        item = recorded.messages[n]
-        recorded.messages[n] = replace(item, values={**item.values, "data": first})
-    for name, grows in [("mcap-ros2-zstd", True), ("mcap-ros2-none", False)]:
-        (tmp_path / name).mkdir()
-        paths = SOURCES[name](tmp_path / name, recorded)
-        summary = mp4ds.pack(paths, tmp_path / name / "dataset")
-        assert (summary.dataset_bytes > 1.05 * summary.source_bytes) == grows
-        assert ("including repeated ones" in summary.larger) == grows
-
-
 # ---------------------------------------------------------------- all of it at once
 
 

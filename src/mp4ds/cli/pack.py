@@ -140,8 +140,6 @@ def print_pack(summary: PackSummary) -> None:
         f"{size_text(summary.dataset_bytes)}{change}, of which messages.mcap "
         f"{size_text(summary.messages_bytes)}"
     )
-    if summary.larger:
-        say(f"larger than its source: {summary.larger}")
 
 
 # ---------------------------------------------------------------- progress of packs

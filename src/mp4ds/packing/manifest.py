@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from mp4ds._version import __version__
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.concat import contents
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.errors import FormatError, SourceError, advising, counted, size_text
+from mp4ds.errors import FormatError, SourceError, advising, counted
 from mp4ds.files.sources import source_name, source_size
 from mp4ds.files.urls import spelled
 from mp4ds.format.fields import MESSAGES_NAME
@@ -46,8 +46,6 @@ from mp4ds.video.encoder import tool_versions
 
 Digest = tuple[int, str]
 """Size in bytes and SHA-256 of a file."""
-
-_LARGER = 1.05  # times its source: anything larger is explained
 
 
 @dataclass
@@ -208,7 +206,7 @@ def summarize(
     if source_bytes is None or part.left_out:
         source_bytes = sum(topic.raw_bytes for topic in part.topics.values())
     with Dataset(part.folder) as made:
-        summary = PackSummary(
+        return PackSummary(
             dataset=target,
             topics=_topics_in(made, part.topics),
             source_bytes=source_bytes,
@@ -221,7 +219,6 @@ def summarize(
             latched=dict(made.latched_before),
             latched_left_out=[topic for topic in too_large if topic not in part.left_out],
         )
-        return replace(summary, larger="" if is_copy else _why_larger(summary, made))
 
 
 def _topics_in(made: Dataset, known: Mapping[str, TopicSummary]) -> list[TopicSummary]:
@@ -255,32 +252,6 @@ def _topics_in(made: Dataset, known: Mapping[str, TopicSummary]) -> list[TopicSu
     for entry in made.manifest.verbatim if made.manifest else ():
         topics[entry.topic].verbatim[entry.reason] = (entry.messages, entry.first)
     return list(topics.values())
-
-
-def _why_larger(summary: PackSummary, made: Dataset) -> str:
-    """Why a dataset is more than 5 % larger than its source; else empty."""
-    earlier = made.manifest.derived_from if made.manifest else []
-    source_bytes, dataset_bytes = summary.source_bytes, summary.dataset_bytes
-    if dataset_bytes <= _LARGER * source_bytes:
-        return ""
-    sidecars = [stream.sidecar for stream in made.streams]
-    packets = [sidecar for sidecar in sidecars if sidecar.body == "packet"]
-    views = sum(one.view.size or 0 for one in packets if one.view)
-    if 2 * views > dataset_bytes - source_bytes:
-        return f"views of JPEG files and video packets take {size_text(views)}"
-    if any(one.profile != LOSSLESS for one in earlier):
-        return "re-encoding the videos of a lossy dataset does not make them as small as they were"
-    if earlier:
-        return "the source dataset was stored in a smaller form"
-    if sum(topic.raw_bytes for topic in summary.topics) <= source_bytes:
-        return "a recording this small takes less space than the index, definitions and sidecars"
-    own = "the source's own compression"
-    if 2 * summary.messages_bytes > dataset_bytes:
-        return f"{own} (such as bz2) stores small messages more compactly than zstd"
-    if packets:
-        kept = "JPEG files and video packets are kept as they are, including repeated ones"
-        return f"{kept}, which {own} stores only once"
-    return f"{own} stores its images more compactly than a video"
 
 
 def folder_size(folder: Path) -> int:

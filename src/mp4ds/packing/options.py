@@ -391,7 +391,6 @@ class PackSummary:
         left_out: Topics left out on request.
         skipped: What the source holds and no dataset can: a phrase -> how many.
         losses: What could not be read of a damaged recording.
-        larger: Why the dataset is larger than its source, if by more than 5 %.
         is_copy: Whether the videos of a dataset were copied; `raw_bytes` of topics are unknown.
         not_copied: Why a dataset's videos were re-encoded without being asked to.
         latched: Latched messages from before the slice, by topic.
@@ -406,7 +405,6 @@ class PackSummary:
     left_out: list[str]
     skipped: dict[str, int]
     losses: list[Loss] = field(default_factory=list)
-    larger: str = ""
     is_copy: bool = False
     not_copied: str = ""
     latched: dict[str, int] = field(default_factory=dict)
