@@ -109,9 +109,8 @@ def printed(
             [dict(zip(COLUMNS, row, strict=True)) for row in rows],
             {"topic": "topic", "type": "type", "content": "text"},
             spare=("gaps", "jitter", "type"),
-            first=4,
         )
-    assert is_cut == bool(columns)
+    assert is_cut == bool(columns and columns < 300)
     return re.sub(r"\x1b\[[0-9;]*m", "", screen.getvalue()).splitlines()
 
 
@@ -130,11 +129,9 @@ def test_a_table_fits_a_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) 
     assert "gaps" not in heading
     assert ("jitter" in heading) == (columns >= 120)
     assert ("sensor_msgs/Image" in lines[0]) == (columns >= 120)
-    assert all(line.startswith("/vehi") for line in lines[:4])
+    assert all(line.startswith("/vehi") for line in lines)
     assert lines[0].split()[0].endswith("compressed" if columns > 40 else "...")
-    assert lines[4] == "66 other topics:"
-    assert len(lines) == 8
-    assert lines[-1].endswith(" ...")
+    assert len(lines) == len(ROWS)
 
 
 # ---------------------------------------------------------------- what is wrong

@@ -191,7 +191,7 @@ def _print_info(result: facts.Info) -> None:
         for topic in (*cameras, *others)
     ]
     spare = ("jitter ms", "longest s", "gaps", "stored", "size", "type")
-    if print_table(rows, _TEXTS, spare=spare, first=len(cameras)):
+    if print_table(rows, _TEXTS, spare=spare):
         say("shortened to fit; in full: --json, or `| less -S`")
     for note in result.notes:
         say(note)

@@ -6,7 +6,6 @@ import json
 import re
 import shutil
 import sys
-import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -97,9 +96,7 @@ def complain(value: object) -> None:
         print(f"mp4ds: {shown(value)}", file=sys.stderr, flush=True)
 
 
-_MOST_ROWS = 20  # of a table on a terminal
 _TEXT = 20  # columns of a text that a terminal shows at least
-_MOST_LINES = 3  # of the names of other rows
 
 
 def print_table(
@@ -107,12 +104,10 @@ def print_table(
     texts: Mapping[str, str],
     *,
     spare: Sequence[str] = (),
-    first: int = 0,
 ) -> bool:
     """Print a table with a line for each row, without the columns that are empty.
 
-    A terminal shows what fits: few rows, short names of types, fewer columns. Other programs get
-    all.
+    A terminal shows what fits: short names of types, fewer columns. Other programs get all.
 
     Args:
         rows: A text for each column, by its heading. All have the same columns; the first one
@@ -120,7 +115,6 @@ def print_table(
         texts: Columns that do not hold numbers -> ``topic``, ``type`` or ``text``: a terminal that
             is too narrow gets short names of types, and texts without their ends.
         spare: Columns that such a terminal leaves out, as many as it has to, in this order.
-        first: How many rows a terminal shows if there are too many for it, the others by name.
 
     Returns:
         Whether anything was shortened or left out.
@@ -128,11 +122,10 @@ def print_table(
     if is_set(QUIET) or not rows:
         return False
     is_terminal = sys.stdout.isatty()
-    most = (first or _MOST_ROWS) if is_terminal and len(rows) > _MOST_ROWS else len(rows)
     columns = {
-        name: [name, *(shown(row[name]) for row in rows[:most])]
+        name: [name, *(shown(row[name]) for row in rows)]
         for name in rows[0]
-        if any(row[name] for row in rows[:most])
+        if any(row[name] for row in rows)
     }
     width = shutil.get_terminal_size().columns if is_terminal else sys.maxsize
     is_cut = False
@@ -146,7 +139,7 @@ def print_table(
         for cells in (columns[own] for own in columns if texts.get(own) == "type"):
             cells[:] = [re.sub(r"[\w.]+/(?:msg/)?", "", cell) for cell in cells]
     with printed():
-        for number in range(most + 1):
+        for number in range(len(rows) + 1):
             line = ""
             for name, cells in columns.items():
                 space = " " * (widths[name] - _width(cells[number]))
@@ -157,13 +150,7 @@ def print_table(
                 is_cut = True
                 line = f"{line[: width - 3]}..."
             print(click.style(line, bold=True) if is_terminal and not number else line)
-    if folded := rows[most:]:
-        heading = next(iter(rows[0]))
-        say(f"{counted(len(folded), f'other {heading}')}:")
-        names = ", ".join(shown(row[heading]) for row in folded)
-        for line in textwrap.wrap(names, width - 2, max_lines=_MOST_LINES, placeholder=" ..."):
-            say(f"  {line}")
-    return is_cut or bool(folded)
+    return is_cut
 
 
 def _width(text: str) -> int:

@@ -110,7 +110,7 @@ def print_pack(summary: PackSummary) -> None:
             "stored in": ", ".join(topic.files) or ("sidecar" if is_modelled else "messages.mcap"),
         }
         rows.append(row)
-    print_table(rows, _TEXTS, spare=_SPARE, first=len(cameras))
+    print_table(rows, _TEXTS, spare=_SPARE)
     for topic in summary.topics:
         for reason, (count, first) in topic.verbatim.items():
             share = f"{count} of {counted(topic.messages, 'message')} stored verbatim"
