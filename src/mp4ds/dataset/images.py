@@ -97,14 +97,6 @@ class Images(ABC):
         """The coordinate frame of a frame's header; empty if unknown."""
         return ""
 
-    def count(self, is_wanted: NDArray[np.bool_] | None = None) -> int:
-        """How many frames can be read, as far as is known.
-
-        Args:
-            is_wanted: Count only these, shape (frames,); None: all.
-        """
-        return len(self) if is_wanted is None else int(is_wanted.sum())
-
     # ------------------------------------------------------------ pictures
 
     @abstractmethod

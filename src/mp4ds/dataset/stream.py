@@ -499,10 +499,9 @@ class Stream(Images):
         """Those of some frames that can be read."""
         return (index for index in indices if self.sound is None or self.sound[index])
 
-    def count(self, is_wanted: NDArray[np.bool_] | None = None) -> int:
+    def count(self) -> int:
         """How many frames can be read, as far as is known."""
-        marks = [mark for mark in (is_wanted, self.sound) if mark is not None]
-        return int(np.logical_and.reduce(marks).sum()) if marks else len(self)
+        return len(self) if self.sound is None else int(self.sound.sum())
 
     def damages(
         self, report: Callable[[int], None] = lambda _: None
