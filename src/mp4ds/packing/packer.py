@@ -149,9 +149,6 @@ class StreamWriter:
         threads: Of an encoder.
         rate: Frames per second, where known.
 
-    Attributes:
-        note: What the user should know of how the video is made; empty if nothing.
-
     Raises:
         Refused: The encoder does not take such pictures.
     """
@@ -175,7 +172,6 @@ class StreamWriter:
         self._digests = array("Q")
         self._clock = PresentationClock()
         self._track = open_track(plan, self._path, self._view_path, seen, threads, rate)
-        self.note = "; ".join(filter(None, (plan.note, self._track.note)))
         self._key = seen.key
 
     @property
@@ -416,8 +412,8 @@ class _Camera:
                 if not route.plans and not route.streams:
                     route.refusal = str(reason)
                 continue
-            if stream.note:
-                self._topic.notes.append(stream.note)
+            if plan.note:
+                self._topic.notes.append(plan.note)
             route.streams.append(stream)
             yield stream
 

@@ -27,9 +27,6 @@ from mp4ds.packing.windows import CrfControl, Scores, WindowCoder
 from mp4ds.video.codecs import (
     LOSSLESS,
     QualityTarget,
-    Recipe,
-    lossless_codecs,
-    recipe_for,
 )
 from mp4ds.video.decoder import PacketPictures
 from mp4ds.video.encoder import Coding, VideoEncoder, predictor
@@ -79,11 +76,9 @@ class Track(ABC):
     """A video being written.
 
     Attributes:
-        note: How it differs from its plan; empty if it does not.
         view: The track of the view, where there is one; written with this one.
     """
 
-    note = ""
     view: Track | None = None
 
     @abstractmethod
@@ -267,31 +262,24 @@ class _EncodedTrack(_PictureTrack):
     ) -> None:
         layout = coding.layout
         width, height = layout.picture_size(*size)
-        refusals: list[str] = []
-        for recipe in _recipes(coding):
-            try:
-                self._encoder = VideoEncoder(
-                    path,
-                    recipe,
-                    picture_format=layout.pixel_format,
-                    width=width,
-                    height=height,
-                    gop=coding.gop,
-                    threads=threads,
-                    rate=rate,
-                    coded=coded,
-                )
-            except EncoderRefusedError as error:
-                path.unlink(missing_ok=True)
-                refusals.append(str(error))
-                continue
-            self.coding = replace(coding, recipe=recipe)
-            self.size = self._encoder.width, self._encoder.height
-            self.options = self._encoder.options
-            if refusals:
-                self.note = f"coded as {recipe.codec}: {refusals[0]}"
-            return
-        raise Refused(refusals[0])
+        try:
+            self._encoder = VideoEncoder(
+                path,
+                coding.recipe,
+                picture_format=layout.pixel_format,
+                width=width,
+                height=height,
+                gop=coding.gop,
+                threads=threads,
+                rate=rate,
+                coded=coded,
+            )
+        except EncoderRefusedError as error:
+            path.unlink(missing_ok=True)
+            raise Refused(str(error)) from None
+        self.coding = coding
+        self.size = self._encoder.width, self._encoder.height
+        self.options = self._encoder.options
 
     def write(self, seen: CameraMessage, tick: int) -> None:
         if seen.source is not None:
@@ -328,7 +316,7 @@ class _ViewedTrack(Track):
     view: _EncodedTrack
 
     def __init__(self, own: Track, open_view: Callable[..., _EncodedTrack]) -> None:
-        self._own, self.note = own, own.note
+        self._own = own
         self.view = open_view()
 
     def prove(self, seen: CameraMessage) -> CameraMessage:
@@ -433,15 +421,6 @@ class _PacketsTrack(_ViewedTrack):
     def close(self) -> None:
         self._show(self._pictures.rest())
         super().close()
-
-
-def _recipes(coding: Coding) -> Iterator[Recipe]:
-    """The recipe, then those of other codecs that can hold its pictures exactly."""
-    yield coding.recipe
-    pixel_format = coding.layout.pixel_format
-    for codec in lossless_codecs(pixel_format) if coding.recipe.lossless else ():
-        if codec != coding.recipe.codec:
-            yield recipe_for(pixel_format, lossless=True, codec=codec)
 
 
 # ---------------------------------------------------------------- aimed at a score
