@@ -497,7 +497,8 @@ def test_damage_is_named(damaged: Path, workers: int, method: str | None) -> Non
     assert dataset[0][RIGHT].shape == (3, 48, 64)
     error = failure(loader(dataset, workers, method, batch_size=8))
     last = str(error).strip().splitlines()[-1]
-    assert f"{damaged}, topic {RIGHT}, frame {BROKEN}: " in last
+    assert f"{damaged}, topic {RIGHT}: " in last
+    assert f"frame {BROKEN} of {RIGHT} (stamp " in last
     assert last.endswith("[decode-failed].")
     assert isinstance(error, SampleError)
     assert isinstance(error, mp4ds.Mp4dsError)

@@ -369,20 +369,15 @@ class OpenCamera:
             outs: Where each goes: of the type of `none`, shape (H, W, C).
 
         Raises:
-            SampleError: One of them cannot be decoded.
+            VideoError: One of them cannot be decoded.
             OptionError: They cannot be returned as requested.
         """
-        try:
-            if self._torchcodec is None and self._dtype != "float32":
-                # arrays share the memory of tensors; those of grey images have no channels
-                rows = [(out.squeeze(-1) if out.shape[-1] == 1 else out).numpy() for out in outs]
-                self._fill(frames, rows)
-                return
-            pixels = self._pixels(frames)
-        except OptionError:
-            raise
-        except Mp4dsError as error:
-            raise self._first_failure(frames, error) from None
+        if self._torchcodec is None and self._dtype != "float32":
+            # arrays share the memory of tensors; those of grey images have no channels
+            rows = [(out.squeeze(-1) if out.shape[-1] == 1 else out).numpy() for out in outs]
+            self._fill(frames, rows)
+            return
+        pixels = self._pixels(frames)
         is_scaled = self._dtype == "float32" and self._view["format"] != "native"
         is_scaled = is_scaled and not pixels.dtype.is_floating_point
         for frame, out in zip(pixels, outs, strict=True):
@@ -412,15 +407,6 @@ class OpenCamera:
         if cached is not None:
             for number, row in missing:
                 cached.store(number, row)
-
-    def _first_failure(self, frames: Sequence[int], error: Mp4dsError) -> SampleError:
-        """Which frame failed, since an error about many does not always say."""
-        for number in sorted(set(frames)):
-            try:
-                self._pixels([number])
-            except Mp4dsError as its:
-                return SampleError(f"frame {number}: {its}")
-        return SampleError(f"one of {len(frames)} frames: {error}")
 
     def statistics(self, frames: NDArray[np.int64], most: int) -> Statistics:
         """Those of the colours of some of the frames, at most so many."""
@@ -523,8 +509,6 @@ class OpenCameras:
                 yield found
         except OptionError:
             raise
-        except SampleError as error:
-            raise SampleError(f"{where}, {error}") from None
         except Mp4dsError as error:
             raise SampleError(f"{where}: {error}") from None
 
