@@ -344,8 +344,9 @@ def test_camera_yuv_is_not_cut(encoding: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- words
 
 MISTAKES: dict[str, tuple[type[Exception], str]] = {
-    "stream[1.0]": (TypeError, "'float' object cannot be interpreted as an integer"),
-    "stream.read(5)": (TypeError, "'int' object is not iterable"),
+    "stream[[1, 2]]": (TypeError, r"not [1, 2]: read([0, 5]) and get([0, 5]) take several"),
+    "stream[1.0]": (TypeError, "at(stamp_ns) a time"),
+    "stream.read(5)": (TypeError, "use [5]"),
     "stream.read([0], resize=224)": (mp4ds.OptionError, "is a factor; for pixels, use (224, 224)"),
     "stream.at(0, tolerance_ns=9)": (mp4ds.FrameNotFoundError, "has no frame within 9 ns near 0 "),
     "stream.at(7, mode='exact')": (mp4ds.FrameNotFoundError, "of exactly 7 ns; the nearest"),

@@ -9,6 +9,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from operator import index as as_integer
+from reprlib import repr as shortened
 from typing import Any, overload
 
 import numpy as np
@@ -511,13 +512,23 @@ class Topic:
             IndexError: There is no such frame.
             TypeError: One is not an integer.
         """
+        if not isinstance(indices, Iterable):
+            raise TypeError(
+                f"frames of {self.topic} are read by a list of numbers: use [{indices!r}]"
+            )
         numbers, count = [], len(self)
         for index in indices.tolist() if isinstance(indices, np.ndarray) else indices:
             if isinstance(index, bool):
                 raise TypeError(
                     "frames are selected by number: for a mask, give np.flatnonzero(mask)"
                 )
-            asked = as_integer(index)
+            try:
+                asked = as_integer(index)
+            except TypeError:
+                raise TypeError(
+                    f"frames of {self.topic} are selected by integers, not {shortened(index)}: "
+                    "read([0, 5]) and get([0, 5]) take several, at(stamp_ns) a time"
+                ) from None
             number = asked + count if asked < 0 else asked
             if not 0 <= number < count:
                 raise IndexError(

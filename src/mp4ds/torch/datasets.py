@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import prod
 from operator import index as as_integer
 from pathlib import Path
+from reprlib import repr as shortened
 from typing import Any, Literal, SupportsIndex, get_args
 
 import numpy as np
@@ -472,7 +473,13 @@ class FrameDataset(Dataset):
             return camera.key_frames
 
     def _number(self, index: SupportsIndex) -> int:
-        number = as_integer(index)
+        try:
+            number = as_integer(index)
+        except TypeError:
+            raise TypeError(
+                f"samples are selected by integers, not {shortened(index)}: for several, use "
+                "torch.utils.data.Subset(dataset, [0, 5])"
+            ) from None
         if not -len(self) <= number < len(self):
             raise IndexError(f"there are {len(self)} samples, and none with number {number}")
         return number % len(self)
