@@ -353,6 +353,12 @@ def test_mosaics(tmp_path: Path) -> None:
         else:  # where the sensor has a colour, interpolation leaves it
             assert image.shape == (48, 64, 3)
             assert (image[::2, ::2, 0] == mosaic[::2, ::2]).all()
+    both = mp4ds.ExportOptions(native=True, resize=0.5)
+    with pytest.raises(mp4ds.OptionError, match="which `native` keeps: use it or `resize`"):
+        mp4ds.export(dataset, "tum", tmp_path / "both", both)
+    other = mp4ds.ExportOptions(topics=["/imu"])
+    with pytest.raises(mp4ds.OptionError, match=r"/imu: a folder of images has no place for"):
+        mp4ds.export(dataset, "images", tmp_path / "other", other)
 
 
 def test_what_png_cannot_hold(tmp_path: Path) -> None:
@@ -366,12 +372,13 @@ def test_what_png_cannot_hold(tmp_path: Path) -> None:
     assert not (tmp_path / "none").exists()
 
 
-def test_names_from_the_recording_do_no_harm(tmp_path: Path) -> None:
+@pytest.mark.parametrize("topic", ["/../../image,=1", "/mp4ds_export.json"])
+def test_names_from_the_recording_do_no_harm(topic: str, tmp_path: Path) -> None:
     made, name = scene("mono8", frames=2), "=1+1,\n../x"
     for place, item in enumerate(made.messages):
         if item.topic == "/cam/image_raw":
             fields = {**item.values, "header": {**item.values["header"], "frame_id": name}}
-            made.messages[place] = replace(item, topic="/../../image,=1", values=fields)
+            made.messages[place] = replace(item, topic=topic, values=fields)
     mp4ds.export(pack_drive(tmp_path, made), "images", tmp_path / "out")
     (folder,) = (path for path in (tmp_path / "out").iterdir() if path.is_dir())
     assert sorted(path.name for path in folder.iterdir()) == ["0.png", "1.png", "stamps.csv"]

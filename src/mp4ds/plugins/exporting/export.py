@@ -22,11 +22,13 @@ from mp4ds.plugins.exporting.folders import (
     write_images,
     write_tum,
 )
-from mp4ds.plugins.exporting.job import ExportJob, ExportOptions, ExportSummary
-
-NOTE_NAME = "mp4ds_export.json"
-"""File in an exported folder that lists what it holds and leaves out."""
-
+from mp4ds.plugins.exporting.job import (
+    NOTE_NAME,
+    UNSELECTED,
+    ExportJob,
+    ExportOptions,
+    ExportSummary,
+)
 
 _FORMATS: dict[str, tuple[str, Callable[..., None]]] = {
     "images": ("a folder of images", write_images),
@@ -112,7 +114,12 @@ def export(
         for job in jobs:
             job.leave_out_rest(name)
         if not summary.messages:
-            why = [f"{topic}: {next(iter(found))}" for topic, found in summary.left_out.items()]
+            why = [
+                f"{topic}: {reason}"
+                for topic, found in summary.left_out.items()
+                for reason in found
+                if reason != UNSELECTED
+            ]
             raise OptionError(
                 f"{name} cannot hold any topic of {jobs[0].dataset.path}: "
                 f"{why[0] if why else 'it has no messages'}."

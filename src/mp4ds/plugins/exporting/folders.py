@@ -18,7 +18,15 @@ from mp4ds.format.models import Calibration
 from mp4ds.format.sidecars import FileNames
 from mp4ds.messages.transforms import TransformCollector, quaternion_of
 from mp4ds.options import seconds_text
-from mp4ds.plugins.exporting.job import IMU, ExportedCamera, ExportJob, Measures, Row, ros_type
+from mp4ds.plugins.exporting.job import (
+    IMU,
+    NOTE_NAME,
+    ExportedCamera,
+    ExportJob,
+    Measures,
+    Row,
+    ros_type,
+)
 from mp4ds.records import Message
 from mp4ds.times import INT64_MIN
 from mp4ds.video.images import encoding_as
@@ -109,6 +117,7 @@ _STAMPS_HEAD = ["file", "stamp_ns", "log_time_ns", "frame_id"]
 def write_images(job: ExportJob) -> None:
     """Write a folder for each topic: its images, named by their numbers, and their times."""
     names, cameras = FileNames(), dict[str, list[ExportedCamera]]()
+    names.name_for(NOTE_NAME)  # is taken
     for camera in job.png_cameras():
         cameras.setdefault(camera.topic, []).append(camera)
     for topic, parts in cameras.items():

@@ -28,6 +28,12 @@ from mp4ds.unpacking.pictures import FrameOptions, files_of, has_inverse_depths
 from mp4ds.video.codecs import MAX_CRF
 from mp4ds.video.images import ImageFile, encoding_as
 
+NOTE_NAME = "mp4ds_export.json"
+"""File in an exported folder that lists what it holds and leaves out."""
+
+UNSELECTED = "not selected"
+"""Why messages of a topic are left out that was not asked for."""
+
 _POSED, _LEROBOT = ("euroc", "tum", "colmap"), ("lerobot",)
 _NS_PER_MS = 1_000_000
 
@@ -448,7 +454,7 @@ class ExportJob:
             totals[channel.topic] += counts.get(channel.id, 0)
         for topic, total in totals.items():
             if not self.options.chosen(topic):
-                reason = "not selected"
+                reason = UNSELECTED
             elif is_camera(channels[topic]):
                 reason = "stored as recorded in messages.mcap, not as video"
             else:
@@ -494,7 +500,12 @@ class ExportJob:
         # depths and other measurements have no colours
         has_colours = encoding_as(known, "rgb") is not None
         colours = "rgb" if has_colours and (self._in_colour or is_converted) else "native"
-        return stream.view(colours, self.options.size_of(stream.topic, stream.image_size))
+        size = self.options.size_of(stream.topic, stream.image_size)
+        if is_native and not is_converted and size is not None:
+            raise OptionError(
+                f"{stream.topic} has Bayer mosaics, which `native` keeps: use it or `resize`."
+            )
+        return stream.view(colours, size)
 
     def _matched(self, cameras: list[ExportedCamera], tolerance_ns: int) -> list[ExportedCamera]:
         """The frames that every camera has, frame n of each taken at the same time."""
