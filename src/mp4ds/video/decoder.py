@@ -498,7 +498,8 @@ def open_video(path: Path) -> VideoFile:
     try:
         return read_video_file(path)
     except FormatError as error:
-        raise SourceError(path, error.problem, _KINDS) from None
+        remedy = "" if "`ffmpeg" in error.problem else _KINDS
+        raise SourceError(path, error.problem, remedy) from None
 
 
 class Clip:

@@ -20,7 +20,10 @@ from mp4ds.files.urls import remote
 from mp4ds.messages.encodings import MAX_SIDE
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import AV_VERSION, CODECS, check_pyav
-from mp4ds.video.mp4 import SampleTable, sample_table_of, why_unreadable
+from mp4ds.video.mp4 import EditedError, SampleTable, sample_table_of, why_unreadable
+
+_ANEW = "-c:v libx264 -qp 0 -bf 0 -fps_mode passthrough -enc_time_base 1:1000000"
+"""How ffmpeg encodes what is shown without loss, in packets that can be copied."""
 
 _Writer = TypeVar("_Writer", bound="Mp4Writer")
 
@@ -130,7 +133,8 @@ class Media:
         try:
             return sample_table_of(self._path)
         except Refused as reason:
-            problem = f"cannot be read: {reason}; `ffmpeg -i FILE -c copy NEW.mp4` writes it anew"
+            how = _ANEW if isinstance(reason, EditedError) else "-c copy"
+            problem = f"cannot be read: {reason}; `ffmpeg -i FILE {how} NEW.mp4` writes it anew"
             raise VideoError("video-unreadable", self._path, problem) from None
         except OSError as error:
             raise_if_scarce(error)

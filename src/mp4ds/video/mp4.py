@@ -25,6 +25,10 @@ class DamagedBoxError(ValueError):
     """A box is missing or contradicts those around it; the text says which."""
 
 
+class EditedError(Refused):
+    """What is shown depends on edits or several descriptions, which a copy by ffmpeg loses."""
+
+
 @dataclass(frozen=True, slots=True)
 class Box:
     """A box's place.
@@ -198,7 +202,7 @@ def _parse_description(file: BinaryIO, stsd: Box) -> SampleEntry:
     data = file.read(stsd.size)
     count = int.from_bytes(data[4:8], "big")
     if count > 1:
-        raise Refused("its frames have several descriptions")
+        raise EditedError("its frames have several descriptions")
     file = io.BytesIO(data)
     entry = next(boxes(file, 8, len(data)), None) if count else None
     if entry is None or entry.size < _ENTRY_BYTES:
@@ -395,7 +399,7 @@ def _parse_track(movie: _Movie, track: Box, file_size: int) -> SampleTable:
         delay, start, end = edit
         shown = (presentation >= start) & (presentation < end)
         if not shown.any():
-            raise Refused("its edit list shows no frames")
+            raise EditedError("its edit list shows no frames")
         order = order[shown]
         shift = delay - int(presentation[order].min())
         decoding += shift
@@ -458,7 +462,7 @@ def _places(movie: _Movie, tables: dict[bytes, Box], sizes: Integers, file_size:
         raise DamagedBoxError("frames lie beyond the end of the file")
     runs = movie.table(_required(tables, b"stsc"), _CHUNKS)
     if np.any(runs["description"] != 1):
-        raise Refused("its frames have several descriptions")
+        raise EditedError("its frames have several descriptions")
     edges = np.append(runs["first"].astype(np.int64) - 1, len(chunks))
     if edges[0] != 0 or np.any(np.diff(edges) <= 0) or np.any(runs["samples"] == 0):
         raise DamagedBoxError("box stsc contradicts the number of chunks")
@@ -522,9 +526,9 @@ def _edit(movie: _Movie, track: Box, timescale: int) -> tuple[int, int, int] | N
         return None
     rows = movie.table(elst, _LONG_EDITS if movie.version(elst) == 1 else _EDITS)
     if len(rows) > _MOST_EDITS:
-        raise Refused("it has several edits")
+        raise EditedError("it has several edits")
     if elst.size != _NO_EDITS + rows.nbytes or not len(rows):
-        raise Refused("its edits are not as many as it says")  # ffmpeg goes by their size
+        raise EditedError("its edits are not as many as it says")  # ffmpeg goes by their size
     movie_scale = movie.timescale(movie.path(movie.box, b"mvhd"))
     # durations are in ticks of the movie, rounded to the nearest of the track
     durations = [
@@ -533,9 +537,9 @@ def _edit(movie: _Movie, track: Box, timescale: int) -> tuple[int, int, int] | N
     ]
     starts = rows["start"].tolist()
     if any(start != -1 for start in starts[:-1]) or starts[-1] < 0:
-        raise Refused("it has several edits")
+        raise EditedError("it has several edits")
     if rows["speed"][-1] != _NORMAL_SPEED or not durations[-1]:
-        raise Refused("it has an edit that freezes a frame or has no end")
+        raise EditedError("it has an edit that freezes a frame or has no end")
     delay, end = sum(durations[:-1]), starts[-1] + durations[-1]
     if max(delay, end) > _LATEST:
         raise DamagedBoxError("an edit is too late")
