@@ -46,7 +46,7 @@ def tags(frame: Any) -> Tags:
 class Tagged:
     """Gives the tags of frames in the place of pictures."""
 
-    coded_size = WIDTH, HEIGHT
+    coded_size, is_view = (WIDTH, HEIGHT), False
 
     def make(self, frame: Any, number: int | None = None, *_: Any) -> Any:
         del number
