@@ -363,9 +363,12 @@ class Stream(Images):
             if is_strict:  # nothing is asked twice then, and what is late by now differs
                 wanted, again = tee(choice(self.columns))
                 own, its = lambda _: wanted, lambda _: again
-            decoded = self._decoded(own, None, is_strict=is_strict)
-            shown = self._view.decodable_pictures(its, is_strict=is_strict)
-            yield from self.predicted(decoded, shown)
+            # in no variables: Python 3.10 leaves this frame in a cycle with what ends it,
+            # and both decoders open until the next collection of garbage
+            yield from self.predicted(
+                self._decoded(own, None, is_strict=is_strict),
+                self._view.decodable_pictures(its, is_strict=is_strict),
+            )
 
     def _decoded(self, choice: Choice, scale: Scale | None, *, is_strict: bool) -> NumberedPictures:
         """The pictures of the video; see `pictures`."""
