@@ -99,6 +99,7 @@ LATER = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", LATER)
 @pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-lz4"])
 def test_images_that_do_not_fit_what_the_first_were_like(
@@ -300,7 +301,7 @@ LEAST = {
 """dB, of a lossy video and a JPEG file of quality 95; 33 for others, whose colours are halved."""
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize(
     ("name", "quality"),
     share([(name, quality) for name in TRANSCODED for quality in QUALITIES], len(QUALITIES)),

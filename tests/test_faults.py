@@ -129,7 +129,8 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     return states
 
 
-@pytest.mark.parametrize("limit", ["pages", pytest.param("files", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", ["pages", "files"])
 def test_a_disk_that_is_full_at_any_moment(
     limit: str, pack: Pack, tmp_path: Path, reached: set[str]
 ) -> None:
@@ -161,6 +162,7 @@ def test_a_disk_that_is_full_at_any_moment(
     assert REACHED[limit] <= reached
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     "name", ["plan.json", "part.json", "messages.mcap", "cam_image_raw.yaml", "dataset.yaml"]
 )
@@ -283,6 +285,7 @@ CHANGES: dict[str, Callable[[Path], object]] = {
 }
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("pack", KINDS, indirect=True)
 def test_a_source_that_changes_while_it_is_packed(change: str, pack: Pack) -> None:

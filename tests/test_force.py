@@ -49,6 +49,7 @@ def arguments(command: tuple[str, ...], made: Path, target: Path) -> list[str]:
     return [*(names.get(word, word) for word in command), *output]
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", FOLDERS)
 def test_a_folder_with_something_else_in_it_is_kept(kind: str, made: Path, tmp_path: Path) -> None:
     target = tmp_path / "out"

@@ -374,6 +374,7 @@ COLUMN_CHANGES: dict[str, tuple[Change, set[str]]] = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", COLUMN_CHANGES)
 def test_a_sidecar_that_contradicts_itself_or_its_video(name: str, pair: Path) -> None:
     change, codes = COLUMN_CHANGES[name]
@@ -585,6 +586,7 @@ def copied(sidecar: Path, folder: Path) -> Path:
     return folder / sidecar.name
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_good_ones_of_every_kind_are_accepted(
     kind: str, pairs: Callable[[str], Path], tmp_path: Path
@@ -798,7 +800,7 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
 }
 
 
-@pytest.mark.one_in(8)
+@pytest.mark.one_in(16)
 @pytest.mark.parametrize("name", FORGED)
 def test_a_forged_sidecar_of_coded_pictures(
     name: str, pairs: Callable[[str], Path], tmp_path: Path

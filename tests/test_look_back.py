@@ -189,7 +189,7 @@ def test_a_disk_that_is_full(
         assert sent[place][1] <= full - round(KEEP * S)
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("what", ["its folder", "a link", "packing", "joining"])
 def test_what_cannot_be_saved(
     what: str, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

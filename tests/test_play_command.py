@@ -118,6 +118,7 @@ def test_keys(drive: Path) -> None:
         assert "20 messages in" in shown.text
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_signals(drive: Path, number: signal.Signals, code: int) -> None:
     """Ctrl-C ends with 0, as `ros2 bag play` does."""

@@ -61,11 +61,9 @@ def test_what_a_disk_may_hold(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["record", "pack-force"]
-    + [
-        pytest.param(name, marks=pytest.mark.slow)
-        for name in TRIALS
-        if name not in ("record", "pack-force")
+    [
+        "record",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in TRIALS if name != "record"),
     ],
 )
 def test_a_sample_of_what_is_left(name: str, tmp_path: Path) -> None:

@@ -106,6 +106,7 @@ def test_packets_on_both_sides_of_a_cut(kind: str, tmp_path: Path) -> None:
         assert len(dataset.streams) == 1
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("case", ["late at a cut", "a clock that jumps back"])
 def test_times_that_are_not_in_order(case: str, tmp_path: Path) -> None:
     """As threads take turns, or a simulation starts over: all is there, by log time."""
@@ -307,6 +308,7 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- splits, pauses
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("most", [{"max_duration": 0.5}, {"max_size": 200_000}])
 def test_datasets_of_a_length_or_size(most: dict[str, Any], tmp_path: Path) -> None:
     paths = write(tmp_path, of=scene("mono8", frames=40, width=160, height=120))
@@ -577,6 +579,7 @@ def killed(left: tuple[list[Path], Path], tmp_path: Path) -> tuple[list[Path], P
     return left[0], tmp_path / "live.recording"
 
 
+@pytest.mark.slow
 def test_no_recovery_while_it_is_packed(killed: tuple[list[Path], Path], tmp_path: Path) -> None:
     """The process that packs may live a little longer than its recorder."""
     _, folder = killed

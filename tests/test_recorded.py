@@ -62,7 +62,7 @@ def check_value(own: Any, value: Any) -> None:
 # ---------------------------------------------------------------- all sources
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("variant", SOURCES)
 def test_messages_of_every_source(variant: str, tmp_path: Path) -> None:
     source = scene("mono8", frames=6)

@@ -108,7 +108,7 @@ KINDS: dict[str, Callable[..., Scene]] = {
 }
 
 
-@pytest.mark.one_in(10)
+@pytest.mark.one_in(20)
 @pytest.mark.parametrize("change", ["fill", "blur"])
 @pytest.mark.parametrize("name", KINDS)
 def test_boxes_alone_change(name: str, change: str, tmp_path: Path) -> None:

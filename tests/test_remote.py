@@ -132,8 +132,8 @@ def round_trip(paths: Sequence[Path], urls: Sequence[str], folder: Path, source:
 
 
 def some(first: int) -> list[Any]:
-    """Every source, of which all but every fifth are slow."""
-    marks = [[] if n % 5 == first else [pytest.mark.slow] for n in range(len(SOURCES))]
+    """Every source, of which all but every tenth are slow."""
+    marks = [[] if n % 10 == first else [pytest.mark.slow] for n in range(len(SOURCES))]
     return [pytest.param(name, marks=mark) for name, mark in zip(SOURCES, marks, strict=True)]
 
 
@@ -348,7 +348,7 @@ def test_a_server_without_ranges(name: str, tmp_path: Path) -> None:
         assert web.sent < 2**26  # what is under way when the connection is closed
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", ["drive.bag", "drive.mcap"])
 @pytest.mark.parametrize("after", [3, 8, 20])
 def test_a_network_that_fails_is_no_damage(
@@ -361,6 +361,7 @@ def test_a_network_that_fails_is_no_damage(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_network_that_fails_while_a_video_is_read(
     packed_bag: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -146,6 +146,7 @@ def test_it_opens_from_the_disk_and_asks_no_network(page: Tab, recorded: Recorde
     assert page.evaluate("document.title") == "drive - mp4ds report"
 
 
+@pytest.mark.slow
 def test_every_frame_is_found_by_its_number(page: Tab, recorded: Recorded) -> None:
     for number in range(FRAMES - 1, -1, -1):
         time = f"mp4dsReport.player.cameras[1].position[{number}]"

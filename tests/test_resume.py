@@ -116,6 +116,7 @@ def test_restart_begins_anew(pack: Pack, stopped: Callable[[int], Path]) -> None
     assert facts(pack.target) == pack.expected
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     "name", ["part.json", "cam_image_raw.mp4", "cam_image_raw.yaml", "-cam_image_raw.yaml"]
 )

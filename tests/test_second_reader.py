@@ -206,7 +206,7 @@ SEEN = [
 ]
 
 
-@pytest.mark.one_in(6)
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize("decoder", ["libaom-av1", "libdav1d"])
 @pytest.mark.parametrize(("path", "view"), SEEN, ids=[view["video"] for _, view in SEEN])
 def test_other_decoders_of_views_give_the_same_samples(
@@ -283,7 +283,7 @@ PACKED = {
 }
 
 
-@pytest.mark.one_in(6)
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize("case", PACKED)
 def test_every_message_of_what_is_packed(case: str, tmp_path: Path) -> None:
     make, write = PACKED[case]

@@ -49,7 +49,7 @@ def hides_frames(dataset: Path) -> bool:
 # ---------------------------------------------------------------- of recordings and datasets
 
 
-@pytest.mark.one_in(20)
+@pytest.mark.one_in(40)
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("way", ["one-pass", "parts", "dataset", "dataset-anew", "unpack"])
 def test_what_is_taken(

@@ -73,7 +73,7 @@ def assert_printed(said: str, printed: str) -> None:
         assert any(due in found for found in lines), f"{line}\n\n{printed}"
 
 
-@pytest.mark.one_in(6)
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: page.stem)
 def test_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

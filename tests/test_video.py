@@ -145,6 +145,7 @@ def decode(path: Path, told: dict[str, Any]) -> list[Any]:
 EVEN = {name: (1 << across, 1 << down) for name, (across, down) in CHROMA_SHIFTS.items()}
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(("codec", "picture_format"), LOSSLESS)
 def test_lossless_is_exact(codec: str, picture_format: str, tmp_path: Path) -> None:
     recipe = recipe_for(picture_format, lossless=True, codec=codec)

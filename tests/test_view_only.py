@@ -113,6 +113,7 @@ TAKEN: dict[str, tuple[str, ...]] = {
 """Commands that give pixels as recorded, or with --quality visual those of the views."""
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", TAKEN)
 def test_pixels_that_differ_are_taken_only_when_asked_for(
     name: str, views: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -292,7 +292,7 @@ def messages(recording: Path, topic: str) -> list[Any]:
         return [(schema.name, message.data) for schema, _, message in found]
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("images", [None, "raw", "jpeg", "png", "compressed-video", "ffmpeg"])
 def test_views_alone_are_unpacked(
     alone: tuple[Path, str], images: str | None, tmp_path: Path

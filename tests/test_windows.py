@@ -83,7 +83,7 @@ OTHERS: dict[str, tuple[Callable[[], Scene], str]] = {
 }
 
 
-@pytest.mark.one_in(12)
+@pytest.mark.one_in(24)
 @pytest.mark.parametrize("name", OTHERS)
 def test_every_source_and_message(name: str, tmp_path: Path, executor: InlineExecutor) -> None:
     recorded, source = OTHERS[name]

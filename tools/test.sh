@@ -16,9 +16,8 @@ report=$(mktemp)
 trap 'kill "$beside" 2>/dev/null || true; rm -f "$report"; exit 130' INT TERM
 .venv/bin/pytest -rs -n 1 -m "network and not slow" "${@:-${networks[@]}}" >"$report" 2>&1 &
 beside=$! outcome=0
-# one process more than cores, as tests wait for processes and sockets for a fifth of their time;
 # the tests of a file stay together, and share what it packs, until a process has nothing to do
-.venv/bin/pytest -rs -n $(($(nproc) + 1)) --dist worksteal -m "not network and not slow" "$@" || outcome=$?
+.venv/bin/pytest -rs -n auto --dist worksteal -m "not network and not slow" "$@" || outcome=$?
 other=0
 wait "$beside" || other=$?
 cat "$report"
