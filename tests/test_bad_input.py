@@ -300,6 +300,7 @@ def test_a_terminal_that_cannot_show_a_topic(tmp_path: Path) -> None:
     assert "topic.mp4" in packed.out
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("job", ["pack", "slice", "lerobot", "evaluate"])
 def test_a_pyav_that_only_reads(
     job: str, demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -417,6 +418,7 @@ TARGETS = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("job", ["pack", "pack-lossy", "demo", *TARGETS])
 def test_a_disk_that_is_full_half_way(job: str, demo: Path, tmp_path: Path) -> None:
     with disk_of(tmp_path / "disk", "size=512k") as disk, unchanged(demo):

@@ -69,7 +69,7 @@ EVEN |= {("full", "32FC1")}
 """Where the two are of about one size, so that either may be taken."""
 
 
-@pytest.mark.one_in(6)
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize(("content", "encoding", "source", "shape"), share(RAW, 6))
 def test_raw_images(content: str, encoding: str, source: str, shape: str, tmp_path: Path) -> None:
     recorded = scene(encoding, frames=FRAMES, content=content, **SHAPES[shape])

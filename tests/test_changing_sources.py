@@ -99,7 +99,7 @@ CASES = [
 ]
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("kind", "change"), CASES)
 @pytest.mark.parametrize("salvage", [False, True])
 def test_a_source_that_changes_while_it_is_packed(

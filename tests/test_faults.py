@@ -529,6 +529,7 @@ def test_a_parallel_pack_that_is_interrupted(
     assert leftovers(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_an_interruption_before_anything_is_finished(long_bag: Path, tmp_path: Path) -> None:
     process = start("pack", long_bag, "-o", tmp_path / "dataset", "--window", 10, "--jobs", 1)
     until(lambda: list((tmp_path / WORK).glob(".0*")), process)

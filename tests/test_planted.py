@@ -140,6 +140,7 @@ PLANTED: dict[str, Callable[[dict[str, Any]], object]] = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("kind", PLANTED)
 def test_a_note_of_another_plan_is_refused(

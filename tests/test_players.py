@@ -295,7 +295,7 @@ def middle_times(dataset: Path) -> list[float]:
 
 
 @pytest.mark.browser
-@pytest.mark.one_in(5)
+@pytest.mark.one_in(10)
 @pytest.mark.parametrize("name", PLAYED)
 def test_a_browser_shows_the_right_frames_in_the_right_colours(
     name: str, player: Tab, datasets: Datasets

@@ -69,6 +69,7 @@ def again(dataset: Path, folder: Path, to: str | None = None) -> Path:
 # ---------------------------------------------------------------- what comes
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("source", "encoding"),
     [

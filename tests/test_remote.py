@@ -180,6 +180,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", ["drive.bag", "drive.mcap"])
 def test_info_reads_the_ends_and_the_index(name: str, large: Path) -> None:
     with web_server(large) as web:
@@ -189,6 +190,7 @@ def test_info_reads_the_ends_and_the_index(name: str, large: Path) -> None:
         assert covered(web.fetched(name)) < 0.2 * size  # of several GB, the same few chunks
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", ["drive.bag", "drive.mcap", "dataset"])
 def test_a_slice_fetches_what_is_in_it(name: str, large: Path, tmp_path: Path) -> None:
     """Of a dataset whole groups of pictures; it is given as the recording's own slice."""
