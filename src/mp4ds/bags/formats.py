@@ -290,7 +290,9 @@ class CombinedReader(BagReader):
                     return {}
                 for channel in part.channels:
                     shared = self._share(number, channel).id
-                    total[shared] = total[shared].plus(stats.get(channel.id, _NO_STATS))
+                    own = stats.get(channel.id, _NO_STATS)
+                    # a damaged part may have channels that its index does not list
+                    total[shared] = total.get(shared, _NO_STATS).plus(own)
         return total
 
     def _times(self) -> Mapping[int, NDArray[np.int64]]:

@@ -484,7 +484,7 @@ class Rosbag2Writer(BagWriter):
         info = self._info()
         inside = dump_yaml(info)
         if isinstance(self._writer, SqliteWriter):
-            self._writer.add_bag_info(info["version"], inside, self._ros_distro)
+            self._writer.add_bag_info(info.get("version", 1), inside, self._ros_distro)
         elif not self._source_has_record:
             self._writer.add_metadata(MetadataRecord(MCAP_RECORD, {"serialized_metadata": inside}))
         self._writer.finish()
