@@ -434,7 +434,7 @@ class Rosbag2Writer(BagWriter):
         old_style = any(has_numeric_qos(topic.qos or "") for topic in self._counts)
         version = NATIVE_QOS_VERSION - 1 if old_style else NEWEST_VERSION
         if self._source:
-            version = self._source.version
+            version = max(0, self._source.version)  # a negative one would leave out all fields
         prefix = "" if version >= 4 else f"{self._name}/"
         duration = {"nanoseconds": max(0, self._end - self._start)}
         start = {"nanoseconds_since_epoch": self._start}
@@ -484,7 +484,7 @@ class Rosbag2Writer(BagWriter):
         info = self._info()
         inside = dump_yaml(info)
         if isinstance(self._writer, SqliteWriter):
-            self._writer.add_bag_info(info.get("version", 1), inside, self._ros_distro)
+            self._writer.add_bag_info(info["version"], inside, self._ros_distro)
         elif not self._source_has_record:
             self._writer.add_metadata(MetadataRecord(MCAP_RECORD, {"serialized_metadata": inside}))
         self._writer.finish()
