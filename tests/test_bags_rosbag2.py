@@ -387,6 +387,7 @@ def test_a_database_alone_tells_that_its_payloads_are_compressed(tmp_path: Path)
 
 METADATA_FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "newer": ({"version": 10}, "metadata version 10"),
+    "negative": ({"version": -3}, "metadata version -3"),
     "storage": ({"storage_identifier": "bolt"}, "storage 'bolt'"),
     "format": ({"compression_mode": "file", "compression_format": "lz4"}, "'lz4'"),
     "outside": ({"relative_file_paths": [".."]}, r"lists '\.\.' as a file"),

@@ -434,7 +434,7 @@ class Rosbag2Writer(BagWriter):
         old_style = any(has_numeric_qos(topic.qos or "") for topic in self._counts)
         version = NATIVE_QOS_VERSION - 1 if old_style else NEWEST_VERSION
         if self._source:
-            version = max(0, self._source.version)  # a negative one would leave out all fields
+            version = self._source.version
         prefix = "" if version >= 4 else f"{self._name}/"
         duration = {"nanoseconds": max(0, self._end - self._start)}
         start = {"nanoseconds_since_epoch": self._start}

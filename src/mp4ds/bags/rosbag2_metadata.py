@@ -155,6 +155,8 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
             reads = f"this mp4ds reads versions up to {NEWEST_VERSION}"
             problem = f"has rosbag2 metadata version {version}; {reads}"
             raise SourceError(path, problem, "Install a newer mp4ds.")
+        if version < 1:
+            raise SourceError(path, f"has rosbag2 metadata version {version}", SALVAGE_REMEDY)
         names = tuple(_base_name(name, path) for name in info.get("relative_file_paths") or [])
         topics = tuple(_topic(item) for item in info.get("topics_with_message_count") or [])
         return BagInfo(
