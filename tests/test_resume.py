@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from commands import run
 from compare import compare
 from in_parts import IN_PARTS, WORK, InlineExecutor, Pack, facts, leftovers, use
 from mp4ds.bags.ros1 import Ros1Reader
@@ -212,6 +213,11 @@ def test_many_recordings_are_one_job(tmp_path: Path, monkeypatch: pytest.MonkeyP
         again = tmp_path / f"{path.stem}-again.bag"
         mp4ds.unpack(tmp_path / "datasets" / path.stem, "bag", again)
         assert compare([path], again) == []
+    result = run("pack", *paths, "-o", f"{tmp_path}/datasets/")
+    assert (result.code, result.out) == (
+        0,
+        f"3 recordings already packed in {tmp_path}/datasets/\n",
+    )
     with pytest.raises(OptionError, match="would both become"):
         pack_each([paths[0], paths[0]], tmp_path / "datasets", IN_PARTS)
     paths[1].replace(paths[0])

@@ -85,7 +85,14 @@ def pack_command(
             summaries = mp4ds.pack_each(sources, into, options, progress=progress)
         else:
             summaries = [mp4ds.pack(sources, output, options, progress=progress)]
-    show(summaries if into else summaries[0], lambda _: [*map(print_pack, summaries)])
+
+    def print_all(_: object) -> None:
+        if into and (there := len(sources) - len(summaries)):
+            say(f"{counted(there, 'recording')} already packed in {path_text(into)}")
+        for summary in summaries:
+            print_pack(summary)
+
+    show(summaries if into else summaries[0], print_all)
 
 
 repack_command = pack_command
