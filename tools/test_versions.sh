@@ -13,7 +13,7 @@ work=$PWD/build/versions
 mkdir -p "$work"
 
 # without the notebook, which packs
-reading=(tests/test_{conformance,layers,library,platforms,random_access,report,torch,version0}.py
+reading=(tests/test_{conformance,layers,library,platforms,random_access,report,torch}.py
   -k "not notebook")
 
 # the interpreter of a version: on the path, or of pyenv
