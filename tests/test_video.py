@@ -300,11 +300,11 @@ def test_encoders_leave_the_machine_to_others(tmp_path: Path) -> None:
     assert set(before) == {os.SCHED_OTHER}
     encoder = VideoEncoder(
         tmp_path / "v.mp4", recipe_for("gray", lossless=False, codec="av1", crf=30),
-        picture_format="gray", width=64, height=48, gop=60, threads=2, rate=30.0,
+        picture_format="gray", width=320, height=240, gop=60, threads=2, rate=30.0,
     )  # fmt: skip
     assert len(scheduling()) > len(before)
     assert set(scheduling()) == {os.SCHED_OTHER}
-    encoder.write((np.zeros((48, 64), np.uint8),), 0)
+    encoder.write((np.zeros((240, 320), np.uint8),), 0)
     encoder.close()
     assert set(scheduling()) == {os.SCHED_OTHER}
 

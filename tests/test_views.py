@@ -211,8 +211,13 @@ def test_the_command_refuses(tmp_path: Path) -> None:
     refused(call(*pack), 2, "of a dataset of crf=40, the videos are what a view would be")
 
 
-def test_a_view_that_no_encoder_makes_leaves_the_name(tmp_path: Path) -> None:
-    (source,) = SOURCES[ROS2](tmp_path / "source", CODED["jpeg-rgb"](frames=2, width=2, height=2))
+@pytest.mark.parametrize("size", [(2, 2), (8, 8), (64, 2)])
+def test_a_view_that_no_encoder_makes_leaves_the_name(
+    size: tuple[int, int], tmp_path: Path
+) -> None:
+    width, height = size
+    images = CODED["jpeg-rgb"](frames=2, width=width, height=height)
+    (source,) = SOURCES[ROS2](tmp_path / "source", images)
     mp4ds.pack(source, tmp_path / "dataset", PackOptions(view="av1"))
     assert [path.name for path in (tmp_path / "dataset").glob("*.mp4")] == [
         "cam_image_raw_compressed.mp4"

@@ -68,6 +68,7 @@ _MATRICES = {"gbr": 0, "bt709": 1, "smpte170m": 6}  # as H.273 numbers them
 _BT709 = 1  # of primaries and transfer characteristics
 _NARROW = 64  # columns
 _NARROW_AV1 = 64  # rows or columns; seen to hang up to 20, not from 32 on
+_TINY_AV1 = 8  # rows and columns
 _SLICE_BYTES = 10_000_000  # of samples, chroma counted whole; FFV1 takes some 14 million
 _SLICE_COUNTS = sorted({rows * n for rows in range(1, 17) for n in range(rows, 2 * rows + 1)})
 
@@ -262,6 +263,12 @@ def open_encoder(context: Any, recipe: Recipe, width: int, height: int, *, threa
         # its look-ahead writes beyond its buffers: seen to crash at 48 columns,
         # and to give wrong pictures up to 32
         raise ValueError("too narrow")
+    if recipe.encoder == "libsvtav1" and (
+        min(width, height) < 4 or max(width, height) <= _TINY_AV1
+    ):
+        # SVT-AV1 4.2 has no minimum: it runs out of memory up to 2, and writes beyond its buffers
+        # where no side has more than 8
+        raise ValueError("too small")
     context.width, context.height = width, height
     context.pix_fmt = recipe.pixel_format
     context.thread_count = threads
