@@ -657,6 +657,10 @@ def test_rows_of_undamaged_pages_come_back(frames: int, injury: str, tmp_path: P
         if not bad & small:
             sound = Counter(key for key, pages in rows if not pages & bad)
             assert not sound - found, damage
+            if injury == "cut" and found:  # and where nothing tells how many there were
+                alone = tmp_path / "alone.db3"
+                alone.write_bytes(damaged)
+                assert not sound - keys(salvaged(alone)[0])
         lost = everything.total() - found.total()
         assert losses or not lost
         if all(loss.messages is not None for loss in losses):

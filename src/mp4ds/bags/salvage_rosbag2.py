@@ -169,7 +169,9 @@ def _index(
             _raise_if_interrupted(tables)
             last = None
         reached = set(keys)
-        for key in range(1, min(last or expected or 0, most) + 1):
+        # Python steps ahead: of the last row that sqlite3 found, it tells the error of the next one
+        final = max(last or expected or 0, keys[-1] + 1 if keys else 0)
+        for key in range(1, min(final, most) + 1):
             if key not in reached:
                 read(f"{query} WHERE id = ?", (key,))
     # a page that is damaged may repeat keys: the first one counts, as for sqlite3
