@@ -422,6 +422,32 @@ def test_packing_that_is_too_slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert compare(paths, again(tmp_path / "live", tmp_path)) == []
 
 
+def test_pieces_that_come_too_fast_wait_for_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An encoder that cannot keep up only takes from receiving."""
+    # of three seconds, the first piece is complete after one and a half
+    monkeypatch.setattr(spool, "WINDOW_NS", 500_000_000)
+    monkeypatch.setattr(spool, "_PACKED_BYTES", 1000)
+    paths = write(tmp_path, of=scene("bayer_rggb8", frames=90, width=64, height=48))
+    is_received, submit = threading.Event(), ProcessExecutor.submit
+    found: list[bool] = []
+
+    def note(self: ProcessExecutor, *call: Any) -> Any:
+        found.append(is_received.is_set())
+        return submit(self, *call)
+
+    monkeypatch.setattr(ProcessExecutor, "submit", note)
+    options = RecordOptions(all=True)
+    with played(node := PlayedNode(paths, rate=1.0), (), tmp_path / "live", options) as recorder:
+        node.stop = lambda: (is_received.set(), recorder.stop())
+        recorder.run()
+    assert found == [True] * len(found)
+    assert len(found) > 3  # pieces, and what joins them
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
+    assert compare(paths, again(tmp_path / "live", tmp_path)) == []
+
+
 @pytest.mark.parametrize("why", ["out of order", "exited with code 7"])
 def test_packing_that_fails(why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The recording goes on, what was recorded stays, and the command that packs it is named."""

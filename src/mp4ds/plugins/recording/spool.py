@@ -31,7 +31,7 @@ from mp4ds.packing.pack import pack
 from mp4ds.packing.spool import SpoolFolder, SpoolSettings
 from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.ros.node import World
-from mp4ds.processes import ProcessExecutor
+from mp4ds.processes import ProcessExecutor, available_cores
 from mp4ds.records import Channel, Loss, Message, MetadataRecord
 from mp4ds.times import INT64_MAX
 
@@ -44,6 +44,9 @@ _LATE_NS = _NS
 
 _GROUP_NS = 60 * _NS
 """How long a piece stays open, at most, for the next key frame of a video."""
+
+_PACKED_BYTES = 250_000_000
+"""Payloads of a window that a core packs in about that time."""
 
 FAILURES = (Mp4dsError, CancelledError, OSError)
 
@@ -122,6 +125,7 @@ class Split:
         self._depends: dict[int, bool] = {}
         self._window_ns = WINDOW_NS
         self._open: list[Piece] = []  # all but the newest take what is late
+        self._waiting: list[Piece] = []  # for the end, to be packed
         self._closed = [self.folder.path / RECORDING_NAME]  # since `written` told of them
         self._count = 0  # of pieces
         self._losses: Sequence[Loss] = ()
@@ -251,7 +255,11 @@ class Split:
 
     def _complete(self, piece: Piece) -> None:
         self._close_piece(piece)
-        self._jobs.submit(self._pack, piece)
+        # packing would not keep up, and take from receiving, at whatever priority
+        if piece.bytes > _PACKED_BYTES * available_cores():
+            self._waiting.append(piece)
+        else:
+            self._jobs.submit(self._pack, piece)
 
     def close(self, announced: Iterable[Channel], losses: Sequence[Loss] = ()) -> None:
         """Complete all pieces, and have the dataset made when they are packed.
@@ -268,6 +276,8 @@ class Split:
             self._open[-1].writer.add_channel(channel)
         while self._open:
             self._complete(self._open.pop(0))
+        for piece in self._waiting:
+            self._jobs.submit(self._pack, piece)
         self._jobs.submit(self._join)
 
     def abandon(self) -> None:
