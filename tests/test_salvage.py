@@ -668,6 +668,29 @@ def test_rows_of_undamaged_pages_come_back(frames: int, injury: str, tmp_path: P
         check_ranges([loss for loss in losses if loss.file == path.name], len(damaged))
 
 
+def test_keys_with_gaps(tmp_path: Path) -> None:
+    """Of a file that was cut off, all rows before the end come back, whatever their keys."""
+    path = tmp_path / "alone.db3"
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,"
+            " serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL)"
+        )
+        database.execute(
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,"
+            " timestamp INTEGER NOT NULL, data BLOB NOT NULL)"
+        )
+        database.execute("INSERT INTO topics VALUES(1, '/a', 'a/msg/A', 'cdr', '')")
+        values = [(3 * n, n, bytes(400)) for n in range(1, 200)]
+        database.executemany("INSERT INTO messages VALUES(?, 1, ?, ?)", values)
+    rows, small, size = places_of(path)
+    data = path.read_bytes()
+    for count in range(max(small) + 1, len(data) // size):
+        path.write_bytes(data[: count * size])
+        sound = Counter(key for key, pages in rows if max(pages) <= count)
+        assert not sound - keys(salvaged(path)[0])
+
+
 def insert(database: sqlite3.Connection, count: int, size: int) -> None:
     (last,) = database.execute("SELECT MAX(timestamp) FROM messages").fetchone()
     rows = [(last + 1 + n, bytes([n % 251]) * size) for n in range(count)]

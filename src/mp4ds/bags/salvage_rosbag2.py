@@ -163,15 +163,15 @@ def _index(
     query = "SELECT id, timestamp FROM messages NOT INDEXED"
     problem = read(f"{query} ORDER BY id")
     if problem:
+        # Python steps ahead: instead of the last row before the damage, it gives the error
+        read(f"{query} WHERE id > ? ORDER BY id LIMIT 1", (keys[-1] if keys else -(2**63),))
         try:
             (last,) = tables.select("SELECT MAX(id) FROM messages").fetchone()
         except sqlite3.Error:
             _raise_if_interrupted(tables)
             last = None
         reached = set(keys)
-        # Python steps ahead: of the last row that sqlite3 found, it tells the error of the next one
-        final = max(last or expected or 0, keys[-1] + 1 if keys else 0)
-        for key in range(1, min(final, most) + 1):
+        for key in range(1, min(last or expected or 0, most) + 1):
             if key not in reached:
                 read(f"{query} WHERE id = ?", (key,))
     # a page that is damaged may repeat keys: the first one counts, as for sqlite3
