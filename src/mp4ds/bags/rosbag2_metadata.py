@@ -156,7 +156,8 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
             problem = f"has rosbag2 metadata version {version}; {reads}"
             raise SourceError(path, problem, "Install a newer mp4ds.")
         if version < 1:
-            raise SourceError(path, f"has rosbag2 metadata version {version}", SALVAGE_REMEDY)
+            problem = f"has rosbag2 metadata version {version}; the first is 1"
+            raise SourceError(path, problem, SALVAGE_REMEDY)
         names = tuple(_base_name(name, path) for name in info.get("relative_file_paths") or [])
         topics = tuple(_topic(item) for item in info.get("topics_with_message_count") or [])
         return BagInfo(

@@ -214,7 +214,10 @@ def mosaic_planes(mosaic: NDArray[np.uint8], pattern: str) -> tuple[NDArray[np.u
     rows, columns = height // 2, width // 2
 
     def beyond_green(colour: str) -> NDArray[np.float32]:
-        """What a colour differs from green, in the middle of each 2 x 2 sites, in 128ths."""
+        """What a colour differs from green, in the middle of each 2 x 2 sites, in 128ths.
+
+        Of 8 bits, these are 32,640 at most: 16 bits hold them.
+        """
         y, x = divmod(pattern.index(colour), 2)
 
         def at(down: int, right: int) -> NDArray[np.int16]:
